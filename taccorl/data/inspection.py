@@ -4,7 +4,7 @@ import contextlib
 import math
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -79,7 +79,8 @@ class TopicSummary:
     """Name of the shipped sensor whose pad frames have the same type and size; None if there is none."""
     counts: tuple[str, tuple[int, ...]] | None = None
     """Wire dtype and shape of a message of unsigned counts that no shipped sensor fits, possibly a pad of another kind."""
-    unusable: int = 0  # Number of the topic's messages that hold no names or no values, which give no sample
+    unusable: int = 0
+    """Number of the topic's messages that give no sample: they hold no names or no values, or come before the first key frame."""
     first: Any = field(default=None, repr=False, compare=False)
     """First message with these names, where the topic has joint states."""
     misfit: str = ""
@@ -358,16 +359,38 @@ def _first_message(
         if t.first is not None:
             return _content(t, t.first, sensors)
         return (
-            _content(t, found.value, sensors) if (found := first()) is not None else {}
+            _content(t, found.value, sensors, reader.messages({t.topic}))
+            if (found := first()) is not None
+            else {}
         )
     except RecordingError as error:
         return {"misfit": str(error)}
 
 
+def _stream_content(messages: Iterable[Message]) -> dict[str, Any]:
+    """How many messages of a video come before the first frame that decodes: recordings begin between two key frames."""
+    stream, taken = None, 0
+    for message in messages:
+        if stream is None:
+            stream = pictures.VideoStream(str(decode.get(message.value, "format")))
+        data = decode.get(message.value, "data")
+        if any(frame is not None for _, frame in stream.decode(message, data)):
+            return {"unusable": taken}
+        taken += 1
+    if stream is not None and any(
+        frame is not None for _, frame in stream.decode(None, None)
+    ):
+        return {"unusable": 0}
+    return {"misfit": f"none of its {taken} messages decodes: no key frame is there"}
+
+
 def _content(
-    t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]
+    t: TopicSummary,
+    value: Any,
+    sensors: dict[str, SensorSpec],
+    messages: Iterable[Message] = (),
 ) -> dict[str, Any]:
-    """Raises RecordingError: a spec could not use it either."""
+    """``messages``: of the topic, read as far as needed. Raises RecordingError: a spec could not use it either."""
     if vector_type(t.type.name) is not None:
         return _vector_content(t, value)
     channel, dtype_of = (
@@ -376,19 +399,7 @@ def _content(
     )
     if t.holds(PICTURES):
         if pictures.is_stream(value):
-            stream = pictures.VideoStream(str(decode.get(value, "format")))
-            frames = [
-                *stream.decode(0, decode.get(value, "data")),
-                *stream.decode(None, None),
-            ]
-            missing = all(frame is None for _, frame in frames)
-            return (
-                {
-                    "misfit": "its first message is no key frame: earlier ones are missing"
-                }
-                if missing
-                else {}
-            )
+            return _stream_content(messages)
         pictures.picture(value, replace(channel, field=None))
         return {}
     if t.holds(JOINTS):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from taccorl.data.decode import from_base64, get, maybe
+from taccorl.data.h264 import FrameNumbers
 from taccorl.data.spec import ChannelSpec
 from taccorl.errors import RecordingError, nearest
 from taccorl.extras import OnUse
@@ -108,7 +109,7 @@ def _rgb(value: Any, channel: ChannelSpec) -> np.ndarray:
         return _raw(value, data, str(encoding))
     if is_stream(value):
         raise RecordingError(
-            f"a frame of {maybe(value, 'format')} that does not decode (an earlier one is missing?)"
+            f"a frame of {maybe(value, 'format')} that does not decode, or refers to one that was lost before it"
         )
     return _compressed(data, str(maybe(value, "format")))
 
@@ -226,13 +227,16 @@ class VideoStream:
         self._codec.thread_count = 1  # a frame comes out when its message goes in
         self._messages: dict[int, Any] = {}
         self._number = 0
+        self._numbers = FrameNumbers() if VIDEO_CODECS[form.lower()] == "h264" else None
+        self._remains: set[int] = set()
+        """Numbers of messages whose frames may show remains of one that was lost."""
 
     def decode(
         self, message: Any, data: bytes | str | None
     ) -> list[tuple[Any, np.ndarray | None]]:
         """Take in the next message, any object that stands for it; return messages whose frames are decoded by now, each with
-        its (rows, columns, 3) uint8 RGB, or None if it does not decode. ``data``: its bytes, or base64 text; None: the last
-        message was taken in."""
+        its (rows, columns, 3) uint8 RGB, or None if it does not decode, or refers to a frame of H.264 that was lost. ``data``:
+        its bytes, or base64 text; None: the last message was taken in."""
         packet = None
         if data is not None:
             try:
@@ -241,6 +245,8 @@ class VideoStream:
                 )
             except RecordingError:
                 return [(message, None)]
+            if self._numbers is not None and self._numbers.take(bytes(packet)):
+                self._remains.add(self._number)
             packet.pts = packet.dts = self._number
             self._messages[self._number] = message
             self._number += 1
@@ -250,10 +256,15 @@ class VideoStream:
             if packet is not None:
                 return [(self._messages.pop(self._number - 1), None)]
             frames = []
+        if self._numbers is not None and any(frame.key_frame for frame in frames):
+            self._numbers.broken = False  # also of a key frame that is no IDR picture
+            self._remains.clear()
         found: list[tuple[Any, np.ndarray | None]] = [
             (
                 self._messages.pop(frame.pts),
-                None if frame.is_corrupt else frame.to_ndarray(format="rgb24"),
+                None
+                if frame.is_corrupt or frame.pts in self._remains
+                else frame.to_ndarray(format="rgb24"),
             )
             for frame in frames
             if frame.pts in self._messages

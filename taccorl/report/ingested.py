@@ -108,10 +108,11 @@ def contents(inventory: Inventory) -> Section:
     lines: list[Value] = [
         f"names of {t.topic}: {', '.join(t.names)}" for t in inventory.topics if t.names
     ]
-    unusable = {t.topic: t.unusable for t in inventory.topics if t.unusable}
     lines += [
-        f"without names or values {name}: {n} messages, which give no sample"
-        for name, n in unusable.items()
+        f"before its first key frame {t.topic}: {t.unusable} messages, which give no picture"
+        if t.is_picture
+        else f"without names or values {t.topic}: {t.unusable} messages, which give no sample"
+        for t in {t.topic: t for t in inventory.topics if t.unusable}.values()
     ]
     lines += [
         Cell(f"not decodable {t.problem}", "warning")
