@@ -83,6 +83,8 @@ class TopicSummary:
     """Number of the topic's messages that give no sample: they hold no names or no values, or come before the first key frame."""
     first: Any = field(default=None, repr=False, compare=False)
     """First message with these names, where the topic has joint states."""
+    like: str = ""
+    """Name of a known type whose fields its first message has, where its own type is not known; else empty."""
     misfit: str = ""
     """Reason why its first message cannot be used, such as a picture in an unknown encoding; empty if it can."""
 
@@ -114,10 +116,9 @@ class TopicSummary:
         return self.stamped and abs(self.skew_s) > SIM_TIME_S
 
     def holds(self, kinds: tuple[str, ...]) -> bool:
-        """Whether the name of its message type ends in one of ``kinds``, in any package."""
-        return any(
-            kind in decode.type_key(self.type.name).rsplit("/", 1)[-1] for kind in kinds
-        )
+        """Whether the name of its message type, or of the one that it is like, ends in one of ``kinds``, in any package."""
+        name = self.like or self.type.name
+        return any(kind in decode.type_key(name).rsplit("/", 1)[-1] for kind in kinds)
 
 
 @dataclass(frozen=True)
@@ -179,6 +180,7 @@ def inspect_source(reader_name: str, source: Source) -> Inventory:
         _summary(topic, types[topic], *times.get(topic, ([], [])))
         for topic in sorted(types)
     ]
+    summaries = [replace(t, like=_like(reader, t)) for t in summaries]
     summaries = [part for t in summaries for part in _by_names(reader, t)]
     sensors = {
         p.stem: load_sensor_spec(p)
@@ -269,6 +271,41 @@ def _summary(
     )
 
 
+def _like(reader: Reader, t: TopicSummary) -> str:
+    """``TopicSummary.like`` of a topic, by the fields of its first message: JSON, and types of one's own."""
+    known = t.holds((*JOINTS, *ARRAYS, *PICTURES, *TEXTS))
+    is_told = known or vector_type(t.type.name) is not None
+    if is_told or t.type.undecodable or t.type.shape is not None or not t.num_messages:
+        return ""
+    try:
+        messages = reader.messages({t.topic}, start_ns=t.first_ns, end_ns=t.first_ns)
+        value = next((m.value for m in messages), None)
+        positions, data = (decode.maybe(value, key) for key in ("position", "data"))
+        if decode.names_of(value) and isinstance(positions, list | np.ndarray):
+            return "JointState"
+        if isinstance(data, str | bytes) and decode.maybe(value, "format"):
+            return "CompressedVideo" if pictures.is_stream(value) else "CompressedImage"
+        if isinstance(data, str | bytes) and decode.maybe(value, "encoding"):
+            return "Image"
+        numbers = np.asarray(data if isinstance(data, list | np.ndarray) else [])
+    except (RecordingError, TypeError, ValueError):
+        return ""
+    if numbers.ndim != 1 or numbers.size == 0 or numbers.dtype.kind not in "iuf":
+        return ""
+    is_count = numbers.dtype.kind in "iu" and numbers.min() >= 0
+    return "UInt16MultiArray" if is_count else "Float64MultiArray"
+
+
+def _layout(value: Any, size: int) -> tuple[int, ...]:
+    """Sizes of the axes that a message states for its ``size`` numbers (``layout.dim``); (size,) where it states none."""
+    dimensions = decode.maybe(decode.maybe(value, "layout"), "dim") or ()
+    try:
+        sizes = tuple(int(decode.get(axis, "size")) for axis in dimensions)
+    except (RecordingError, TypeError, ValueError):
+        return (size,)
+    return sizes if len(sizes) > 1 and math.prod(sizes) == size else (size,)
+
+
 def _by_names(reader: Reader, t: TopicSummary) -> list[TopicSummary]:
     """One summary for each set of names that occurs in a topic of joint states: several drivers may publish on one topic."""
     if (
@@ -299,7 +336,7 @@ def _by_names(reader: Reader, t: TopicSummary) -> list[TopicSummary]:
         for n, (log, stamp, first) in times.items()
     ]
     return [
-        replace(part, names=names, unusable=unusable, first=first)
+        replace(part, names=names, unusable=unusable, first=first, like=t.like)
         for part, names, first in parts
     ] or [t]
 
@@ -395,7 +432,7 @@ def _content(
         return _vector_content(t, value)
     channel, dtype_of = (
         ChannelSpec(topic=t.topic, rate_hz=1.0, field="data"),
-        t.type.name.lower(),
+        (t.like or t.type.name).lower(),
     )
     if t.holds(PICTURES):
         if pictures.is_stream(value):
@@ -419,7 +456,7 @@ def _content(
         if dtype in dtype_of:
             size = decode.pad_counts(decode.get(value, "data"), dtype).size
             return (
-                {"num_values": size, "counts": (dtype, (size,))}
+                {"num_values": size, "counts": (dtype, _layout(value, size))}
                 if size
                 else {"misfit": "data is empty"}
             )

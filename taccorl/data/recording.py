@@ -599,8 +599,13 @@ def load_recording(source: Source, spec: RecordingSpec, scratch: Path) -> Record
             if reader.damage
             else hint
         )
+        way_out = (
+            ". Of another robot? `taccorl ingest inspect RECORDING --draft=spec.yaml` drafts its spec"
+            if present and not reader.damage
+            else ""
+        )
         raise RecordingError(
-            f"topics in the spec but without messages in the recording: {', '.join(missing)} ({hint})"
+            f"topics in the spec but without messages in the recording: {', '.join(missing)} ({hint}){way_out}"
         )
     for name in spec.channels:
         _check_type(spec, name, present)

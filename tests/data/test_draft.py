@@ -468,3 +468,84 @@ def test_what_cannot_be_decoded_is_named_once(stand_in: tuple[Path, Any]) -> Non
     inventory = Inventory(Source(Path("a\nb.h5"), ()), "hdf5", (nameless,), {}, ())
     assert "  # not used: /x: not read" in draft_specs(inventory).recording
     assert draft_specs(inventory).recording.startswith(r"# Draft from a\nb.h5: ")
+
+
+def json_recording(path: Path, layout: list[int]) -> Path:
+    """JSON messages of types of one's own: joints, their targets, JPEG in base64, and 64 whole numbers with a layout."""
+    sizes = [{"label": "axis", "size": n, "stride": 64} for n in layout]
+    rng = np.random.default_rng(0)
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channels = {
+            topic: writer.register_channel(
+                topic,
+                "json",
+                writer.register_schema(kind, "jsonschema", b'{"type": "object"}'),
+            )
+            for topic, kind in (
+                ("/arm/state", "MyJoints"),
+                ("/arm/target", "MyJoints"),
+                ("/pad/left", "Pad"),
+                ("/cam/front", "Shot"),
+            )
+        }
+        for k in range(120):
+            joints = {"name": ["pan", "lift"], "position": [k / 100, -k / 200]}
+            counts = {
+                "layout": {"dim": sizes},
+                "data": rng.integers(0, 900, 64).tolist(),
+            }
+            sent = {
+                "/arm/state": joints,
+                "/arm/target": joints,
+                "/pad/left": counts,
+                "/cam/front": {"format": "png", "data": PIXEL},
+            }
+            for topic, message in sent.items():
+                at = START_NS + k * 10_000_000
+                data = json.dumps(message).encode()
+                writer.add_message(
+                    channels[topic], log_time=at, publish_time=at, data=data
+                )
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("layout", "shape"),
+    [([4, 16], (4, 16)), ([8, 8], (8, 8)), ([], (64,)), ([4, 4], (64,))],
+)
+def test_types_of_ones_own_are_drafted_by_their_fields(layout, shape, tmp_path):
+    ((reader, source),) = find_sources(json_recording(tmp_path / "a.mcap", layout))
+    inventory = inspect_source(reader, source)
+    of = {t.topic: t for t in inventory.topics}
+    assert of["/arm/state"].names == of["/arm/target"].names == ("pan", "lift")
+    assert of["/pad/left"].counts == ("uint16", shape)
+    assert of["/cam/front"].is_picture and not of["/cam/front"].problem
+    recording = yaml.safe_load(draft_specs(inventory).recording)
+    assert recording["features"] == {
+        "observation.state": {"channels": ["arm_state"], "align": "asof"},
+        "action": {"channels": ["arm_target"], "align": "asof"},
+        "observation.images.cam_front": {"channels": ["cam_front"], "align": "asof"},
+        "observation.tactile": {"channels": ["pad_left"], "align": "asof"},
+    }
+
+
+def test_what_is_like_nothing_is_not_drafted(tmp_path):
+    """A battery's state is neither a joint nor a picture, nor an array."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("Battery", "jsonschema", b'{"type": "object"}')
+        channel = writer.register_channel("/battery", "json", schema)
+        for k in range(5):
+            data = json.dumps({"voltage": 24.0, "data": None, "name": "main"}).encode()
+            writer.add_message(
+                channel, log_time=START_NS + k, publish_time=START_NS + k, data=data
+            )
+        writer.finish()
+    ((reader, source),) = find_sources(path)
+    (topic,) = inspect_source(reader, source).topics
+    assert (topic.like, topic.names, topic.num_values) == ("", (), None)
