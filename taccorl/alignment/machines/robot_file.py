@@ -39,7 +39,7 @@ from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Payload
 from taccorl.sim.effects.scaled import OF_A_TURN, bounded
 from taccorl.sim.settings import check_numbers
-from taccorl.sim.twin_file import EffectsDocument, effect_entry
+from taccorl.sim.twin_file import EffectsDocument, effect_entry, write_whole
 
 TODO = "TODO"  # Placeholder for a value that only the user knows; a file that contains it is rejected
 REMOVABLE = 0.95
@@ -471,6 +471,30 @@ class Robot:
             default_flow_style=None,
             width=120,
         )
+
+    def save(self, path: Path) -> None:
+        """Write the robot file, as a whole or not at all: the text of the file that was loaded with what changed, so that its
+        comments stay; ``text`` where that would not say the same. Raises TaccorlError: the folder cannot be written to."""
+        from taccorl.alignment.machines.kept_text import with_changes
+
+        path, after = Path(path), self.text(path)
+        try:
+            loaded = self.path.read_bytes().decode()
+            kept = with_changes(loaded, load_robot(self.path).text(self.path), after)
+        except (OSError, UnicodeDecodeError, TaccorlError):
+            kept = None
+        if kept is not None:
+            beside = path.with_name(f".{path.name}.kept.yaml")
+            try:
+                write_whole(beside, kept)
+                if load_robot(beside).text(path) == after:
+                    write_whole(path, kept)
+                    return
+            except TaccorlError:
+                pass
+            finally:
+                beside.unlink(missing_ok=True)
+        write_whole(path, after)
 
     def digest(self) -> str:
         """Digest of a robot, 16 hexadecimal digits; equal only if file and model are equal."""

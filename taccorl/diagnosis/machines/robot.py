@@ -63,7 +63,6 @@ from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Payload
 from taccorl.sim.effects.scaled import Scale, bounded
-from taccorl.sim.twin_file import write_whole
 
 How = tuple[Measurements, GainsAre, Diagnosed]
 """What ``RobotMachine.reconsidered`` is given besides the findings."""
@@ -98,7 +97,7 @@ class RobotMachine(Machine):
         return cls(load_robot(path), Path(path).stem)
 
     def save(self, path: Path) -> None:
-        write_whole(path, self.robot.text(path))
+        self.robot.save(path)
 
     def digest(self) -> str:
         return self.robot.digest()

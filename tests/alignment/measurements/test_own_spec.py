@@ -105,7 +105,7 @@ def test_what_is_not_to_be_seen_is_refused_with_the_way_out(changes, words, tmp_
 
 def test_hdf5_has_no_names_and_asks_for_a_spec(tmp_path):
     path = write_hdf5(tmp_path / "a.h5", arrays())
-    with pytest.raises(RecordingError, match="--draft=spec.yaml"):
+    with pytest.raises(RecordingError, match=r"--draft=spec\.yaml"):
         read(path)
 
 
