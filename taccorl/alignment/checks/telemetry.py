@@ -31,6 +31,7 @@ from taccorl.alignment.checks.registry import (
     check,
     check_names,
     find,
+    is_cause,
     run,
     without_explained,
 )
@@ -293,7 +294,8 @@ def one_cause(
     that any other error of the signal explains.
     ``found``: name of a recording → its findings. ``rates``: as in ``Trial``."""
     every = [f for own in found.values() for f in own if f.severity == "error"]
-    result = without_explained(found, [f for f in every if f.check not in CORRECTED])
+    causes = [f for own in found.values() for f in own if is_cause(f)]
+    result = without_explained(found, [f for f in causes if f.check not in CORRECTED])
     wrong = {
         f.feature
         for own in result.values()
@@ -348,4 +350,10 @@ def one_cause(
             elif cause in errors[name]:
                 kept.append(errors[name][cause])
             result[name] = kept
-    return result
+    columns = [f for f in every if f.check in CORRECTED]
+    of_all = {name for name, listed in CHECKS.items() if listed.of_all}
+    explained = {e for f in columns for e in CHECKS[f.check].explains} & of_all
+    return {
+        name: [f for f in own if f.check not in explained]
+        for name, own in result.items()
+    }

@@ -177,9 +177,9 @@ def wrapped(m: Measurement) -> Measurement:
     return dataclasses.replace(m, measured=wrap(m.measured), target=wrap(m.target))
 
 
-def repeated(m: Measurement) -> Measurement:
-    """12 of 100 rows hold the readings of the row before."""
-    rows = np.flatnonzero(np.random.default_rng(5).random(ROWS) < 0.12)
+def repeated(m: Measurement, share: float = 0.12, seed: int = 5) -> Measurement:
+    """12 of 100 rows, or another share, hold the readings of the row before."""
+    rows = np.flatnonzero(np.random.default_rng(seed).random(ROWS) < share)
     measured, effort = m.measured.copy(), m.effort.copy()
     for row in rows[rows > 0]:
         measured[row], effort[row] = measured[row - 1], effort[row - 1]
@@ -264,7 +264,7 @@ PLANTED: dict[str, tuple[Planted, set[tuple[str, str]]]] = {
         lambda m: dataclasses.replace(m, target=m.target[:, [1, 1]]),
         {("copied_target", "lift")},
     ),
-    "rows repeated": (repeated, {("repeated_rows", "lift")}),
+    "rows repeated": (repeated, {("repeated_rows", n) for n in NAMES}),
     "filled row": (changed("measured", 0, filled), {("not_finite", "lift")}),
     "zero off": (changed("measured", 0, lambda q: q + 0.3), {("start_offset", "lift")}),
     "position early": (
@@ -301,6 +301,28 @@ def test_a_planted_fault_is_named_and_nothing_else(
 ) -> None:
     plant, expected = PLANTED[fault]
     assert named(findings(arm, plant(CLEAN))) == expected
+
+
+def with_speeds(m: Measurement) -> Measurement:
+    return dataclasses.replace(m, velocity=np.gradient(m.measured, m.time_s, axis=0))
+
+
+def test_a_wrong_unit_of_a_position_is_no_wrong_unit_of_its_velocity(
+    arm: RobotMachine,
+) -> None:
+    """In degrees its slope is 57.3 times the velocity, whose column is right."""
+    plant, expected = PLANTED["one joint in degrees"]
+    assert named(findings(arm, plant(with_speeds(CLEAN)))) == expected
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3])
+def test_repeated_rows_are_no_late_answer_and_no_dropped_commands(
+    arm: RobotMachine, share: float
+) -> None:
+    """Readings of the row before are late by ``share`` of a row on average."""
+    found = findings(arm, repeated(with_speeds(CLEAN), share, seed=7))
+    assert {f.check for f in found if f.check != "not_judged"} == {"repeated_rows"}
+    assert named(found) == {("repeated_rows", name) for name in NAMES}
 
 
 def test_efforts_without_the_carried_weight_are_named(tmp_path: Path) -> None:
