@@ -419,7 +419,7 @@ def _to_and_fro(values: np.ndarray) -> float:
     "warning",
     "repeated_rows",
     needs="position",
-    explains=("late_answer", "dropped_commands"),
+    explains=("late_answer", "dropped_commands", "does_not_repeat"),
 )
 def check_repeated_rows(t: Trial) -> Iterator[Finding]:
     """Single rows in which a joint in motion reads the number of the row before: a driver that was polled too early."""

@@ -36,7 +36,7 @@ from taccorl.alignment.checks.registry import (
     without_explained,
 )
 from taccorl.alignment.checks.trial import MOVED, Trial, least_motion
-from taccorl.alignment.checks.unrepeated import check_repeatability
+from taccorl.alignment.checks.unrepeated import check_clock_rates, check_repeatability
 from taccorl.alignment.measurements.folder import copies
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.repeats import Overlay, overlay
@@ -127,6 +127,9 @@ def check_measurements(
     sound = [
         m for m in measurements if not any(f.severity == "error" for f in found[m.name])
     ]
+    for name, finding in check_clock_rates(sound):
+        found[name].append(finding)
+    sound = [m for m in sound if not any(f.severity == "error" for f in found[m.name])]
     moves = {m.name: {*np.flatnonzero(np.ptp(m.target, axis=0))} for m in sound}
     for name, finding in _slower_rows(sound, rates or {}):
         found[name].append(finding)

@@ -342,6 +342,27 @@ def test_efforts_without_the_carried_weight_are_named(tmp_path: Path) -> None:
     assert named(findings(machine, whole)) == set()
 
 
+@pytest.mark.parametrize("factor", [0.995, 1.02])
+@pytest.mark.parametrize("slow", [0, 1, 2])
+def test_another_rate_of_a_clock_is_named_in_its_recording(
+    factor: float, slow: int
+) -> None:
+    """Of three recordings of one motion the first one, which the others repeat, may be the one with the slow clock."""
+    names = ("a.csv", "b.csv", "c.csv")
+    made = [
+        dataclasses.replace(
+            CLEAN, name=name, measured=CLEAN.measured + 1e-4 * k, repeat_of="a.csv"
+        )
+        for k, name in enumerate(names)
+    ]
+    made[0] = dataclasses.replace(made[0], repeat_of=None)
+    assert not any(named(own) for own in check_measurements(made).values())
+    made[slow] = dataclasses.replace(made[slow], time_s=factor * CLEAN.time_s)
+    found = {name: named(own) for name, own in check_measurements(made).items()}
+    assert found.pop(names[slow]) == {("clock_rate", "time")}
+    assert not any(found.values())
+
+
 @pytest.mark.parametrize(
     ("parts", "least_ms", "most_ms"),
     [(500, 0.0, 0.02), (5, 0.5, 1.0)],  # steps of 0.01 and of 1 ms
