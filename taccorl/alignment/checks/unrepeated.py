@@ -99,8 +99,8 @@ def check_clock_rates(
             if m is usual or _agree(usual, m) or not _agree(usual, stretched):
                 continue
             text = (
-                f"its commands last {own_s:.3f} s, those of {usual.name}, the same ones, {usual_s:.3f} s: the clock of one of the "
-                f"two runs at another rate. Multiply the times of {m.name} by {factor:.5g} if that of {usual.name} is "
+                f"its commands last {own_s:.3f} s, those of {usual.name}, the same ones, {usual_s:.3f} s: the clock of one of "
+                f"the two runs at another rate. Multiply the times of {m.name} by {factor:.5g} if that of {usual.name} is "
                 "right, or log both by one clock"
             )
             yield m.name, find("clock_rate", "time", text)
