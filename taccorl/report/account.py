@@ -5,6 +5,7 @@ A pure function of the results. ``texts.yaml`` has the lines; docs/diagnosis.md 
 of the confidence.
 """
 
+import dataclasses
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -84,6 +85,12 @@ def moved(d: Diagnosis) -> dict[str, Quantity]:
         f.name: Quantity.of(d.base[f.name], f.unit, ends[f.name])
         for f in _needed(d, apart)
     }
+
+
+def with_moved(d: Diagnosis) -> Diagnosis:
+    """``d``, whose status says that numbers of the file are off where they have to move."""
+    is_off = d.status == "nothing_missing" and moved(d)
+    return dataclasses.replace(d, status="numbers_off") if is_off else d
 
 
 def _needed(d: Diagnosis, apart: list[Free]) -> list[Free]:
@@ -183,7 +190,19 @@ def _title(of: _Part) -> list[Fact]:
     missing = [_placed(of.d, name) for name in added(of.d)]
     drifting = list(dict.fromkeys(drift.number for drift in of.seen.drifts))
     values = {"missing": missing, "numbers": of.numbers, "drifting": drifting}
-    return [fact(of.kind, part=of.part, **values)]
+    return [fact(of.kind, part=of.part, changes=_changes(of.d), **values)]
+
+
+def _changes(d: Diagnosis) -> list[str]:
+    """Each number of the file that is off, with its value there and the fitted one."""
+    fitted = {name: (d.start[name], q.shown) for name, q in moved(d).items()}
+    stated = {c.name: (c.before, Quantity.of(c.after, c.unit).shown) for c in d.changed}
+    return [
+        f"{name} {before:.4g} → {after}"
+        if math.isfinite(before)
+        else f"{name} (not stated) → {after}"
+        for name, (before, after) in (fitted | stated).items()
+    ]
 
 
 def _placed(d: Diagnosis, name: str) -> str:

@@ -11,6 +11,7 @@ from taccorl.diagnosis.machines.machine import Finding, numbers_of
 from taccorl.diagnosis.problems.joint_problem import OF_RECORDINGS
 from taccorl.diagnosis.search.identifiable import TIMING_S, Known
 from taccorl.diagnosis.search.result import Diagnosis, Evidence, Round
+from taccorl.report.account import with_moved
 from taccorl.report.evidence import added, effect_class, grade
 from taccorl.report.fact import Account, Fact, Quantity, unit_words
 from taccorl.report.section import Cell, Picture, Section, Value, change, floors
@@ -105,7 +106,7 @@ def _errors(f: Finding) -> Section:
         "by the effects",
     )
     return Section(
-        text=[d.words, f"noise floor {f.noise}", chosen],
+        text=[with_moved(d).words, f"noise floor {f.noise}", chosen],
         heads=heads,
         rows=rows,
         right=range(1, 5),

@@ -27,7 +27,7 @@ from taccorl.diagnosis.search.result import Diagnosis, may_go_on
 from taccorl.errors import TaccorlError
 from taccorl.lineage.destinations import check_writable
 from taccorl.report import compared, page
-from taccorl.report.account import account, moved
+from taccorl.report.account import account, moved, with_moved
 from taccorl.report.diagnosed import account_section, diagnosed, next_section
 from taccorl.report.evidence import Seen, added
 from taccorl.report.fact import Account, Fact
@@ -412,6 +412,7 @@ def _pad_matches(c: Comparison | None) -> list[dict[str, Any]]:
 
 def _diagnosis(d: Diagnosis) -> dict[str, Any]:
     """Without the fits, whose residuals are as long as the recordings."""
+    d = with_moved(d)
     left = ("before", "after", "effects", "offers")
     kept = {
         f.name: getattr(d, f.name) for f in dataclasses.fields(d) if f.name not in left

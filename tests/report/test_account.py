@@ -27,7 +27,7 @@ from taccorl.diagnosis.search.result import (
 )
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.diagnosis.search.solve import PartFinding
-from taccorl.report.account import account, is_explained, moved, share_gone
+from taccorl.report.account import account, is_explained, moved, share_gone, with_moved
 from taccorl.report.diagnosed import account_section
 from taccorl.report.evidence import Seen, added, grade, simpler_twin
 from taccorl.report.fact import (
@@ -681,6 +681,9 @@ def test_gains_alone_are_the_first_facts_and_explain_the_error(nothing):
     assert a.ids[:3] == ("numbers_off", "error", "changed")
     assert (kp.values["name"], kp.values["before"]) == ("kp", 394.0)
     assert kp.values["after"] == moved(d)["kp"]
+    assert a.facts[0].values["changes"] == ["kp 394 → 241 N·m/rad"]
+    assert with_moved(d).status == "numbers_off", "kp of the file changes"
+    assert with_moved(nothing).status == "nothing_missing"
     assert is_explained(d) and share_gone(d) > 0.999
     rest = with_errors(changed(d, status="something_else"), before=100.0, after=2.41)
     assert share_gone(rest) == pytest.approx(1.0 - 0.0241**2) and is_explained(rest)

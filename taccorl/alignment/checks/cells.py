@@ -124,7 +124,8 @@ def _of_recording(config: CellsConfig, m: CellMeasurement) -> Iterator[Finding]:
         yield find("beyond_ends", name, text)
 
 
-@check("error", "constant_load", "no_rest", "saturated", "no_reading", "wrong_sign")
+@check("error", "constant_load", "no_rest", "saturated", "no_reading")
+@check("error", "wrong_sign", of_all=True)
 def _together(s: CellSet, exchanged: set[int]) -> Iterator[Finding]:
     """What all fit recordings together lack.
     ``exchanged``: cells whose columns are exchanged; the sign of their gain is not judged."""

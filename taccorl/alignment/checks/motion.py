@@ -246,7 +246,7 @@ def check_motion(t: Trial) -> Iterator[Finding]:
     "error",
     "frozen_channel",
     "saturated_channel",
-    explains=(*FOLLOWS_FROM, "velocity_unit"),
+    explains=(*FOLLOWS_FROM, "velocity_unit", "wrong_sign"),
 )
 @check("warning", "sticking_joint", "blocked")
 def _stuck(m: Measurement, j: int) -> Iterator[Finding]:
@@ -415,11 +415,15 @@ def _to_and_fro(values: np.ndarray) -> float:
     return float(min(up, down))
 
 
-@check("warning", "repeated_rows", needs="position")
+@check(
+    "warning",
+    "repeated_rows",
+    needs="position",
+    explains=("late_answer", "dropped_commands", "does_not_repeat"),
+)
 def check_repeated_rows(t: Trial) -> Iterator[Finding]:
     """Single rows in which a joint in motion reads the number of the row before: a driver that was polled too early."""
     m = t.m
-    shares: dict[str, float] = {}
     for j in t.moving:
         step = np.diff(m.measured[:, j])
         fast = np.abs(step) > STICK_STEPS * max(float(m.quantum[j]), 1e-12)
@@ -427,15 +431,12 @@ def check_repeated_rows(t: Trial) -> Iterator[Finding]:
         count = int((around & (step[1:-1] == 0.0)).sum())
         share = count / max(int(around.sum()), 1)
         if count >= REPEATED[0] and share > REPEATED[1]:
-            shares[m.signals[j]] = share
-    if shares:
-        each = ", ".join(f"{name} {share:.0%}" for name, share in shares.items())
-        text = (
-            f"rows repeat the reading of the row before while the joint moves ({each} of its rows in motion): they were polled "
-            "faster than the driver measures. Log only new readings with the driver's stamps, or leave repeated rows out: gaps "
-            "of a table are bridged"
-        )
-        yield find("repeated_rows", next(iter(shares)), text)
+            text = (
+                f"{m.signals[j]}: rows repeat the reading of the row before while the joint moves ({share:.0%} of its rows in "
+                "motion): they were polled faster than the driver measures. Log only new readings with the driver's stamps, or "
+                "leave repeated rows out: gaps of a table are bridged"
+            )
+            yield find("repeated_rows", m.signals[j], text)
 
 
 @check("warning", "not_at_rest", "start_offset", needs="position")

@@ -24,6 +24,7 @@ class Check:
     explains: tuple[
         str, ...
     ] = ()  # Checks whose findings about the same signal may follow from this one
+    of_all: bool = False  # True: its findings depend on the columns of every signal
 
 
 CHECKS: dict[
@@ -33,11 +34,15 @@ _FUNCTIONS: dict[str, list[Callable[..., Any]]] = {}
 
 
 def check[F: Callable[..., Any]](
-    severity: Severity, *names: str, needs: str = "", explains: tuple[str, ...] = ()
+    severity: Severity,
+    *names: str,
+    needs: str = "",
+    explains: tuple[str, ...] = (),
+    of_all: bool = False,
 ) -> Callable[[F], F]:
     """Decorator that puts checks into the list, in this order. ``needs``: what a trial needs for the function to run (see
-    ``run``); "": another decorator of the function says so, or other code calls it. ``explains``: as in ``Check``."""
-    CHECKS.update(dict.fromkeys(names, Check(severity, explains)))
+    ``run``); "": another decorator of the function says so, or other code calls it. ``explains``, ``of_all``: as in ``Check``."""
+    CHECKS.update(dict.fromkeys(names, Check(severity, explains, of_all)))
 
     def listed(function: F) -> F:
         if needs:
@@ -65,13 +70,22 @@ def find(
     return Finding(name, severity or CHECKS[name].severity, feature, text, rows, topic)
 
 
+def is_cause(f: Finding) -> bool:
+    """Whether other findings may follow from this one: an error, or a warning that its check never makes graver."""
+    listed = CHECKS.get(f.check)
+    is_warning = listed is not None and f.severity == listed.severity == "warning"
+    return f.severity == "error" or is_warning
+
+
 def without_explained(
     found: Mapping[str, Sequence[Finding]], causes: Sequence[Finding]
 ) -> dict[str, list[Finding]]:
     """``found`` (recording → findings) without what ``causes`` explain: findings about the same signal in any recording, or
-    about any signal if the cause has none."""
+    about any signal if the cause has none, or if the finding depends on all signals."""
     explained = {(e, f.feature) for f in causes for e in CHECKS[f.check].explains}
-    everywhere = {check for check, feature in explained if not feature}
+    everywhere = {
+        check for check, feature in explained if not feature or CHECKS[check].of_all
+    }
     return {
         name: [
             f

@@ -31,11 +31,12 @@ from taccorl.alignment.checks.registry import (
     check,
     check_names,
     find,
+    is_cause,
     run,
     without_explained,
 )
 from taccorl.alignment.checks.trial import MOVED, Trial, least_motion
-from taccorl.alignment.checks.unrepeated import check_repeatability
+from taccorl.alignment.checks.unrepeated import check_clock_rates, check_repeatability
 from taccorl.alignment.measurements.folder import copies
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.repeats import Overlay, overlay
@@ -126,6 +127,9 @@ def check_measurements(
     sound = [
         m for m in measurements if not any(f.severity == "error" for f in found[m.name])
     ]
+    for name, finding in check_clock_rates(sound):
+        found[name].append(finding)
+    sound = [m for m in sound if not any(f.severity == "error" for f in found[m.name])]
     moves = {m.name: {*np.flatnonzero(np.ptp(m.target, axis=0))} for m in sound}
     for name, finding in _slower_rows(sound, rates or {}):
         found[name].append(finding)
@@ -293,7 +297,8 @@ def one_cause(
     that any other error of the signal explains.
     ``found``: name of a recording → its findings. ``rates``: as in ``Trial``."""
     every = [f for own in found.values() for f in own if f.severity == "error"]
-    result = without_explained(found, [f for f in every if f.check not in CORRECTED])
+    causes = [f for own in found.values() for f in own if is_cause(f)]
+    result = without_explained(found, [f for f in causes if f.check not in CORRECTED])
     wrong = {
         f.feature
         for own in result.values()
@@ -348,4 +353,10 @@ def one_cause(
             elif cause in errors[name]:
                 kept.append(errors[name][cause])
             result[name] = kept
-    return result
+    columns = [f for f in every if f.check in CORRECTED]
+    of_all = {name for name, listed in CHECKS.items() if listed.of_all}
+    explained = {e for f in columns for e in CHECKS[f.check].explains} & of_all
+    return {
+        name: [f for f in own if f.check not in explained]
+        for name, own in result.items()
+    }

@@ -12,6 +12,7 @@ turns of the target are play or sticking.
 Letters in shapes: T rows, J signals, B blocks of rows.
 """
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -30,6 +31,7 @@ from taccorl.alignment.measurements.noise_floor import (
     noise_floor,
     without_beginning,
 )
+from taccorl.alignment.measurements.repeats import overlay
 from taccorl.data.finding import Finding, not_judged
 from taccorl.errors import TaccorlError
 
@@ -71,6 +73,52 @@ class Pair(NamedTuple):
                 float(self.time_s[k]),
                 float(self.time_s[k + rows - 1]),
             )
+
+
+@check("error", "clock_rate")
+def check_clock_rates(
+    measurements: Sequence[Measurement],
+) -> Iterator[tuple[str, Finding]]:
+    """Recordings that differ from others of their motion by the rate of their clock: the commands agree once the times of one are
+    multiplied by a factor. The usual rate is the median of the motion, of two recordings that of rows of the whole set."""
+    groups: dict[str, list[Measurement]] = {}
+    for m in measurements:
+        groups.setdefault(m.repeat_of or m.name, []).append(m)
+    rows_s = float(np.median([m.period_s for m in measurements] or [0.0]))
+    for group in groups.values():
+        lasts_s = np.array([_lasts_s(m) for m in group])
+        if len(group) == 2:  # the one whose rows are as elsewhere, else the first
+            off = [abs(m.period_s - rows_s) for m in group]
+            usual_s = lasts_s[int(off[1] < off[0])]
+        else:
+            usual_s = float(np.median(lasts_s))
+        usual = group[int(np.abs(lasts_s - usual_s).argmin())]
+        for m, own_s in zip(group, lasts_s, strict=True):
+            factor = usual_s / own_s if own_s > 0.0 else 1.0
+            stretched = dataclasses.replace(m, time_s=m.time_s * factor)
+            if m is usual or _agree(usual, m) or not _agree(usual, stretched):
+                continue
+            text = (
+                f"its commands last {own_s:.3f} s, those of {usual.name}, the same ones, {usual_s:.3f} s: the clock of one of "
+                f"the two runs at another rate. Multiply the times of {m.name} by {factor:.5g} if that of {usual.name} is "
+                "right, or log both by one clock"
+            )
+            yield m.name, find("clock_rate", "time", text)
+
+
+def _lasts_s(m: Measurement) -> float:
+    """Time from the first change of a target to the last one [s]; 0 without any."""
+    rows = np.flatnonzero(np.any(np.diff(m.target, axis=0) != 0.0, axis=1))
+    return float(m.time_s[rows[-1]] - m.time_s[rows[0]]) if len(rows) else 0.0
+
+
+def _agree(a: Measurement, b: Measurement) -> bool:
+    """Whether the commands of two recordings are the same ones at the same times."""
+    try:
+        overlay(a, b)
+    except TaccorlError:
+        return False
+    return True
 
 
 @check("warning", "dropped_commands", "does_not_repeat", "drift")

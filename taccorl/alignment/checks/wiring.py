@@ -82,9 +82,11 @@ FOLLOWS_FROM = (
         "not_judged",
         "start_offset",
         "beyond_limits",
+        "velocity_unit",
     ),
+    "wrong_sign",
 )
-"""Checks whose findings about a signal may follow from a column that is wrong."""
+"""Checks whose findings about a signal may follow from a column that is wrong; ``wrong_sign`` at any signal."""
 OF_ANOTHER_JOINT = (
     *(
         "dead_channel",
@@ -375,7 +377,18 @@ def all_in_degrees(
 
 
 @check("error", "degrees", explains=(*FOLLOWS_FROM, *OF_ANOTHER_JOINT))
-@check("error", "unit", explains=("start_offset", "beyond_limits", "effort_unit"))
+@check(
+    "error",
+    "unit",
+    explains=(
+        "start_offset",
+        "beyond_limits",
+        "effort_unit",
+        "velocity_unit",
+        "wrong_inertia",
+        "wrong_sign",
+    ),
+)
 def _beyond_range(m: Measurement) -> Iterator[Finding]:
     """Positions where the robot cannot be: another unit."""
     for j, (name, unit) in enumerate(zip(m.signals, m.units, strict=True)):

@@ -141,6 +141,19 @@ def test_exchanged_targets_are_named_at_a_joint_that_is_held_too(
     assert not {check for check, _ in found} & {"dead_channel", "swapped_joints"}
 
 
+@pytest.mark.parametrize("joint", ["shoulder", "elbow"])
+def test_a_position_against_its_command_is_no_joint_that_is_turned_in_all_columns(
+    machine: RobotMachine, joint: str
+) -> None:
+    """The weight is reversed in the model as well, which the reversed position explains."""
+    sign = [-1.0 if name == joint else 1.0 for name in JOINTS]
+    made = [
+        changed(m, ("measured",), [0, 1, 2], np.array(sign))
+        for m in recordings(machine)
+    ]
+    assert errors(machine, made) == {("reversed", joint)}
+
+
 def test_a_joint_that_is_turned_in_all_columns_is_named_where_its_weight_shows_it(
     machine: RobotMachine,
 ) -> None:

@@ -18,6 +18,7 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.tables import load_table_spec, read_table
 from taccorl.data.finding import Finding
+from taccorl.diagnosis.comparison.replays import replay_joints
 from taccorl.diagnosis.machines.robot import RobotMachine
 
 ARM = """<mujoco><compiler angle="radian"/><worldbody>
@@ -51,11 +52,12 @@ class Pendulum:
         return self.mass * 9.81 * (self.x * math.cos(q) + self.z * math.sin(q))
 
     def answer(
-        self, target: np.ndarray, *, carried: bool
+        self, target: np.ndarray, *, carried: bool, parts: int = PARTS
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(T,) positions and efforts of kp and kd; ``carried``: the drive adds the weight, and reports no part of it."""
+        """(T,) positions and efforts of kp and kd; ``carried``: the drive adds the weight, and reports no part of it;
+        ``parts``: steps of the integration in a row."""
         inertia = self.inertia + self.mass * (self.x**2 + self.z**2)
-        step_s, speed, before = 1 / (RATE_HZ * PARTS), 0.0, float(target[0])
+        step_s, speed, before = 1 / (RATE_HZ * parts), 0.0, float(target[0])
         at = before
         for _ in range(0 if carried else 200):
             at = before + self.weight(at) / self.kp
@@ -63,7 +65,7 @@ class Pendulum:
         for goal in target.tolist():
             rows.append((at, self.kp * (before - at) - self.kd * speed))
             before = goal
-            for _ in range(PARTS):
+            for _ in range(parts):
                 torque = self.kp * (goal - at) - self.kd * speed
                 weight = 0.0 if carried else self.weight(at)
                 speed += step_s * (torque + weight) / inertia
@@ -177,9 +179,9 @@ def wrapped(m: Measurement) -> Measurement:
     return dataclasses.replace(m, measured=wrap(m.measured), target=wrap(m.target))
 
 
-def repeated(m: Measurement) -> Measurement:
-    """12 of 100 rows hold the readings of the row before."""
-    rows = np.flatnonzero(np.random.default_rng(5).random(ROWS) < 0.12)
+def repeated(m: Measurement, share: float = 0.12, seed: int = 5) -> Measurement:
+    """12 of 100 rows, or another share, hold the readings of the row before."""
+    rows = np.flatnonzero(np.random.default_rng(seed).random(ROWS) < share)
     measured, effort = m.measured.copy(), m.effort.copy()
     for row in rows[rows > 0]:
         measured[row], effort[row] = measured[row - 1], effort[row - 1]
@@ -264,7 +266,7 @@ PLANTED: dict[str, tuple[Planted, set[tuple[str, str]]]] = {
         lambda m: dataclasses.replace(m, target=m.target[:, [1, 1]]),
         {("copied_target", "lift")},
     ),
-    "rows repeated": (repeated, {("repeated_rows", "lift")}),
+    "rows repeated": (repeated, {("repeated_rows", n) for n in NAMES}),
     "filled row": (changed("measured", 0, filled), {("not_finite", "lift")}),
     "zero off": (changed("measured", 0, lambda q: q + 0.3), {("start_offset", "lift")}),
     "position early": (
@@ -303,6 +305,28 @@ def test_a_planted_fault_is_named_and_nothing_else(
     assert named(findings(arm, plant(CLEAN))) == expected
 
 
+def with_speeds(m: Measurement) -> Measurement:
+    return dataclasses.replace(m, velocity=np.gradient(m.measured, m.time_s, axis=0))
+
+
+def test_a_wrong_unit_of_a_position_is_no_wrong_unit_of_its_velocity(
+    arm: RobotMachine,
+) -> None:
+    """In degrees its slope is 57.3 times the velocity, whose column is right."""
+    plant, expected = PLANTED["one joint in degrees"]
+    assert named(findings(arm, plant(with_speeds(CLEAN)))) == expected
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3])
+def test_repeated_rows_are_no_late_answer_and_no_dropped_commands(
+    arm: RobotMachine, share: float
+) -> None:
+    """Readings of the row before are late by ``share`` of a row on average."""
+    found = findings(arm, repeated(with_speeds(CLEAN), share, seed=7))
+    assert {f.check for f in found if f.check != "not_judged"} == {"repeated_rows"}
+    assert named(found) == {("repeated_rows", name) for name in NAMES}
+
+
 def test_efforts_without_the_carried_weight_are_named(tmp_path: Path) -> None:
     """The model holds 2 kg at 0.18 m: up to 3.5 N·m, beside 2 N·m of kp and kd."""
     file = FILE.replace("joints:", "gravity_compensation: 1.0\njoints:")
@@ -316,6 +340,47 @@ def test_efforts_without_the_carried_weight_are_named(tmp_path: Path) -> None:
     )
     whole = dataclasses.replace(m, effort=m.effort + weight)
     assert named(findings(machine, whole)) == set()
+
+
+@pytest.mark.parametrize("factor", [0.995, 1.02])
+@pytest.mark.parametrize("slow", [0, 1, 2])
+def test_another_rate_of_a_clock_is_named_in_its_recording(
+    factor: float, slow: int
+) -> None:
+    """Of three recordings of one motion the first one, which the others repeat, may be the one with the slow clock."""
+    names = ("a.csv", "b.csv", "c.csv")
+    made = [
+        dataclasses.replace(
+            CLEAN, name=name, measured=CLEAN.measured + 1e-4 * k, repeat_of="a.csv"
+        )
+        for k, name in enumerate(names)
+    ]
+    made[0] = dataclasses.replace(made[0], repeat_of=None)
+    assert not any(named(own) for own in check_measurements(made).values())
+    made[slow] = dataclasses.replace(made[slow], time_s=factor * CLEAN.time_s)
+    found = {name: named(own) for name, own in check_measurements(made).items()}
+    assert found.pop(names[slow]) == {("clock_rate", "time")}
+    assert not any(found.values())
+
+
+@pytest.mark.parametrize(
+    ("parts", "least_ms", "most_ms"),
+    [(500, 0.0, 0.02), (5, 0.5, 1.0)],  # steps of 0.01 and of 1 ms
+)
+def test_replays_have_no_offset_in_time_and_plants_of_long_steps_lead_by_half_a_step(
+    arm: RobotMachine, parts: int, least_ms: float, most_ms: float
+) -> None:
+    """A plant that adds h a to the velocity and h v to the position is at a h² n (n + 1) / 2 after n steps of a constant
+    acceleration: half a step early, and more with damping. So far a delay fitted to it is too short."""
+    rows = [
+        joint.answer(goal, carried=False, parts=parts)[0]
+        for joint, goal in zip(JOINTS, CLEAN.target.T, strict=True)
+    ]
+    plant = dataclasses.replace(CLEAN, measured=np.column_stack(rows))
+    replay = replay_joints(arm.robot, arm._whole(plant), NAMES).reported
+    speed = np.gradient(replay, 1 / RATE_HZ, axis=0)
+    early_s = ((plant.measured - replay) * speed).sum(axis=0) / (speed**2).sum(axis=0)
+    assert (early_s > 1e-3 * least_ms - 1e-5).all() and (early_s < 1e-3 * most_ms).all()
 
 
 def lines(found: list[Finding], check: str) -> str:
