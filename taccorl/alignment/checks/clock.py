@@ -385,7 +385,7 @@ def check_against_twin(
         floor: signal → noise floor of positions [rad, m].
         uncertain: signals of drives with unknown numbers (gains, k_t, back-EMF), which diagnose fits. Wrong numbers also shift
             the replay, so that a lead of these signals is only a warning.
-        changed: function that returns the twin's positions (T,) of a signal with another inertia, stiffness and damping. A
+        changed: function that returns the twin's positions (T,) of a signal with another inertia, stiffness and damping. A shift
             that these explain, or that they leave uncertain, is not reported.
         rivals: function that returns, by the names of effects, the twin's positions (T,) of a signal with a little of an effect
             that takes lag off. A lead that one of them explains as well as a shift is only a warning.
@@ -464,16 +464,16 @@ def beside_onsets(
     clock: Mapping[str, Sequence[Finding]],
 ) -> dict[str, tuple[Finding, ...]]:
     """Findings of ``check_against_twin``, recording → findings. If a joint leads its replay in two or more recordings, but starts
-    its steps on time in another (``same_onset``), clocks agree: errors become warnings that name gains; ``UNDECIDED`` goes. A
-    shift fitted to whole motions that is a warning goes, too: dry friction and play are late, but begin their steps on time."""
+    its steps on time in another (``same_onset``), clocks agree: errors become warnings that name gains; ``UNDECIDED`` goes."""
     all_of = [f for own in clock.values() for f in own]
     leads = Counter(
         f.feature
         for f in all_of
         if f.check == UNDECIDED or (f.check == SHIFTED and f.severity == "error")
     )
-    on_time = {f.feature for f in all_of if f.check == "same_onset"}
-    same = {signal for signal in on_time if leads[signal] > 1}
+    same = {
+        f.feature for f in all_of if f.check == "same_onset" and leads[f.feature] > 1
+    }
     why = (
         "though its steps begin on one clock: gains that are not the stated ones (`gains: fitted` fits them) or a missing effect "
         "look like this"
@@ -486,13 +486,8 @@ def beside_onsets(
             f, severity="warning", text=f"{f.text.partition('): ')[0]}), {why}"
         )
 
-    def contradicted(f: Finding) -> bool:
-        of_motion = f.check == SHIFTED and f.topic != CLOCK and f.severity == "warning"
-        undecided = f.check == UNDECIDED and f.feature in same
-        return undecided or (of_motion and f.feature in on_time)
-
     return {
-        n: tuple(said(f) for f in own if not contradicted(f))
+        n: tuple(said(f) for f in own if f.check != UNDECIDED or f.feature not in same)
         for n, own in clock.items()
     }
 
@@ -574,7 +569,7 @@ def _by_steps(
         f"velocity_feedforward). If the search does not add that: {_earlier_targets(m, -onset.delay_s, whole=True)}"
     )
     text = f"{signal} begins its steps {where}, {rows:.1f} rows, after the twin's replay, though effects are missing: {way}"
-    return find(SHIFTED, signal, text, severity="warning", topic=CLOCK)
+    return find(SHIFTED, signal, text, severity="warning")
 
 
 def _rival(

@@ -662,20 +662,6 @@ def test_leads_beside_steps_on_one_clock_are_gains_but_one_lead_alone_is_its_fil
     )
 
 
-def test_a_motion_that_looks_late_is_no_shift_where_its_steps_begin_on_time() -> None:
-    """As with dry friction. Another joint's, and one that steps themselves show, stay."""
-    late, of_steps = (
-        find("shifted_from_twin", "a", "a comes late", severity="warning", topic=topic)
-        for topic in ("", "clock")
-    )
-    onset = find("same_onset", "a", "a begins its steps on one clock")
-    other = dataclasses.replace(late, feature="b")
-    clock = {"1": [late, other], "2": [of_steps], "steps": [onset]}
-    left = {"1": (other,), "2": (of_steps,), "steps": (onset,)}
-    assert beside_onsets(clock) == left
-    assert beside_onsets({"1": [late]}) == {"1": (late,)}
-
-
 def test_onsets_whose_shape_differs_are_not_judged() -> None:
     """As with play: the first 20 mrad of 0.2 rad go by at once, from either end."""
     target = steps(4, 0.2)
