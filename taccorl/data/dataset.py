@@ -27,7 +27,7 @@ from taccorl.data.origin import NOT_STATED, Origin
 from taccorl.data.spec import DatasetSpec, FeatureSpec
 from taccorl.data.strict_yaml import SPEC_VERSION, Document, check_version
 from taccorl.data.timing import MOST_S
-from taccorl.data.video_files import frame_problems, frame_shift, video_frames
+from taccorl.data.video_files import frame_problems, video_frames
 from taccorl.errors import DatasetError, TaccorlError, no_such_path
 
 PROVENANCE = Path(
@@ -309,19 +309,6 @@ class Dataset:
                     for p in frame_problems(path, due)
                 ]
         return problems
-
-    def video_shifts(self) -> dict[tuple[int, str], float]:
-        """(episode, camera) → seconds by which its ``from_timestamp`` is before the frame of its first row, where that is
-        less than half a frame and explains why its rows have no frames."""
-        found = {}
-        for key in self.cameras:
-            for index in range(self.num_episodes):
-                video = self.video(index, key)
-                due_s = video.from_s + np.arange(video.num_frames) / self.spec.fps
-                shift_s = frame_shift(video.path, due_s)
-                if shift_s is not None:
-                    found[index, key] = shift_s
-        return found
 
     def _file(self, template: str, prefix: str, index: int, **names: str) -> Path:
         entry = self.entry(index)

@@ -50,7 +50,7 @@ from taccorl.data.finding import (
 )
 from taccorl.data.joining import like, set_column
 from taccorl.data.lerobot_format import STATED
-from taccorl.data.video_files import TOLERANCE_S
+from taccorl.data.video_files import TOLERANCE_S, frame_shift
 from taccorl.errors import DatasetError
 
 CHECKED = (
@@ -471,7 +471,7 @@ def repair(dataset: Dataset, copy: Path) -> None:
         copy,
         ignore=lambda folder, names: {"manifest.json", ".verified.json"} & set(names),
     )
-    shifts = dataset.video_shifts()
+    shifts = _video_shifts(dataset)
     first = np.cumsum([0, *(dataset.num_rows(i) for i in range(dataset.num_episodes))])
     at = 0
     for path in data_files(copy):
@@ -526,6 +526,19 @@ def repair(dataset: Dataset, copy: Path) -> None:
     ]
     lerobot_format.restore_picture_statistics(copy, bad)
     lerobot_format.write_exact_statistics(copy)
+
+
+def _video_shifts(dataset: Dataset) -> dict[tuple[int, str], float]:
+    """(episode, camera) → seconds by which its ``from_timestamp`` is before the frame of its first row, where that is less
+    than half a frame and explains why its rows have no frames."""
+    found = {}
+    for key in dataset.cameras:
+        for index in range(dataset.num_episodes):
+            video = dataset.video(index, key)
+            due_s = video.from_s + np.arange(video.num_frames) / dataset.spec.fps
+            if (shift_s := frame_shift(video.path, due_s)) is not None:
+                found[index, key] = shift_s
+    return found
 
 
 def _with(table: pa.Table, key: str, values: np.ndarray) -> pa.Table:

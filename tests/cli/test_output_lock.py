@@ -25,7 +25,6 @@ with released_at_the_end():
     print("has it", flush=True)
     sys.stdin.readline()
 """
-AXIS = "kind: axis\nname: slide\nunit: m\ninertia: 40.0\nkp: 4.0e+4\nkd: 2000.0\nlimits: [-0.15, 0.15]\nforce_unit_n: 10.0\n"
 
 
 def start(folder: Path, *words: str) -> "subprocess.Popen[str]":
@@ -153,17 +152,8 @@ def test_every_option_out_is_locked_where_it_is_parsed(tmp_path: Path):
 def test_of_two_commands_into_one_place_one_writes_and_the_other_refuses(
     where: list[str], tmp_path: Path
 ):
-    (tmp_path / "drive.yaml").write_text(AXIS)
     program = "import sys; from taccorl.cli.main import main; sys.exit(main())"
-    words = [
-        "-c",
-        program,
-        "surrogate",
-        "--twin=drive.yaml",
-        "--secret=1",
-        "--speed=0.5",
-        *where,
-    ]
+    words = ["-c", program, "surrogate", "--twin=drive.yaml", "--secret=1", *where]
     both = [start(tmp_path, *words) for _ in range(2)]
     said = [process.communicate()[1] for process in both]
     assert sorted(process.returncode for process in both) == [0, 2], said

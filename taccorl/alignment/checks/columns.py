@@ -45,9 +45,9 @@ SMOOTH_S = 0.1
 """Window of the quadratics whose slopes are velocity and acceleration [s]."""
 MOST_ROWS = 200
 """Rows of one recording at which the model is evaluated."""
-NO_WEIGHT = 0.2
-"""Efforts lack the carried weight if what they lack is a multiple of it that is within so much of 1, with a correlation above 1
-less so much. A choice."""
+NO_WEIGHT, SURELY_NONE = 0.2, 0.05
+"""Efforts lack the carried weight if what they lack is a multiple of it that is within the first of 1, with a correlation above
+1 less the first, and in one comparison above 1 less the second: with another centre of mass it was 0.93. Choices."""
 COLUMNS = ("measured", "target", "velocity", "effort")
 """Arrays (T, J) of a measurement that hold a joint's columns."""
 EXCHANGES = (
@@ -156,7 +156,7 @@ def _without_weight(
     with np.errstate(divide="ignore", invalid="ignore"):
         share, likeness = cross / weight, cross / np.sqrt(rest * weight)
     near = (np.abs(share - 1.0) < NO_WEIGHT) & (likeness > 1.0 - NO_WEIGHT)
-    return bool(near.all())
+    return bool(near.all() and likeness.max() > 1.0 - SURELY_NONE)
 
 
 def _exchanged(

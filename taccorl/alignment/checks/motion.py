@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from taccorl.alignment.checks.first_order import LEAST_ROWS, fit_first_order
 from taccorl.alignment.checks.registry import check, find
@@ -70,8 +71,8 @@ rows: beyond it the friction would have given way. A choice."""
 
 
 REPEATED = 10, 0.02
-"""Least number of rows that repeat the one before, with more than ``STICK_STEPS`` steps of the encoder on both sides, and least
-share of the rows in motion. Choices."""
+"""Least number of rows that repeat the one before, with more than ``STICK_STEPS`` steps of the encoder on both sides and a motion
+of as many times the noise, which repeats numbers by chance, and least share of the rows in motion. Choices."""
 FILLER, FILLER_LEAST = 5.0, 0.02
 """A position of one row is no measurement if the way to it is so many times the longest way between other rows, and so long [rad,
 m], while the target stays. Choices: a joint that breaks free does not come back in the next row."""
@@ -426,7 +427,12 @@ def check_repeated_rows(t: Trial) -> Iterator[Finding]:
     m = t.m
     for j in t.moving:
         step = np.diff(m.measured[:, j])
+        # of a normal distribution; a quarter of the rows may be repeated
+        bends = np.nanquantile(np.abs(np.diff(step)), 0.2) / 0.253
+        noise = float(bends) / math.sqrt(6.0)
+        least = STICK_STEPS * max(float(m.quantum[j]), noise, 1e-12)
         fast = np.abs(step) > STICK_STEPS * max(float(m.quantum[j]), 1e-12)
+        fast &= np.abs(uniform_filter1d(step, 5)) > least
         around = fast[:-2] & fast[2:] & (np.sign(step[:-2]) == np.sign(step[2:]))
         count = int((around & (step[1:-1] == 0.0)).sum())
         share = count / max(int(around.sum()), 1)

@@ -107,12 +107,14 @@ def fitted_delays(folder: Path, row_steps: int) -> tuple[np.ndarray, np.ndarray]
 @pytest.mark.slow
 def test_the_interval_of_a_delay_at_30_hz_holds_the_truth(tmp_path: Path) -> None:
     """Nine of ten: of ten intervals of 95 % fewer hold the truth in 9 % of tries. The upper half, which no unknown age of the
-    positions widens, is below 1 ms on average, 3 % of a row: an interval that holds everything says nothing."""
+    positions widens, is below 1.2 ms on average, 4 % of a row (times of the loop that may move are in it): an interval that
+    holds everything says nothing."""
     truth_s, delays = fitted_delays(tmp_path, STEPS)
     value, low, high = delays.T
     print(summary(truth_s, delays))
     assert (
-        sum((low <= truth_s) & (truth_s <= high)) >= 9 and np.mean(high - value) < 1e-3
+        sum((low <= truth_s) & (truth_s <= high)) >= 9
+        and np.mean(high - value) < 1.2e-3
     )
 
 
