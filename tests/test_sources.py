@@ -16,6 +16,7 @@ FOLDERS = ("taccorl", "pipelines", "tests", "data_specs", "configs", "docs")
 UNLISTED = {
     "rerun": "rerun-sdk",
     "rerun_cli": "rerun-sdk",
+    "ruamel": "ruamel-yaml",
 }  # a .pth file puts them on the path
 
 

@@ -335,7 +335,8 @@ def test_what_inspect_prints_and_drafts_has_no_control_characters(tmp_path, caps
     ].values()
     assert channel["topic"] == TOPIC
     assert channel["pick"] == [f"joint{RED}"]
-    assert r"# not used: /other\x1b[31m" in (tmp_path / "mine.yaml").read_text()
+    spare = r'# other_31m: {topic: "/other\u001b[31m", type: my_msgs/Unknown'
+    assert spare in (tmp_path / "mine.yaml").read_text()
 
 
 def test_errors_reports_and_lists_of_what_is_not_read_have_none_either(
