@@ -178,7 +178,7 @@ def _turns(episode: Episode) -> Iterator[Finding]:
             "a glitch, or rows are missing"
             if turn is None
             else f"an angle that passes a full turn, {turn:.4g} {TURNS[turn]}: add the turns before training "
-            "(`unwrap: true` in a recording spec or a columns file)"
+            "(`unwrap: true` of a columns file does it for compare and diagnose)"
         )
         text = f"{names[i]} goes from {values[row, i]:.4g} to {values[row + 1, i]:.4g} between rows {row} and "
         text += f"{row + 1}, {jump / span:.0%} of its range; {large.sum()} such steps: {what}"
